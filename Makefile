@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect compare-detectors train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-learned-alignment bench-monte-carlo bench-stream bench-suppress bench-robust bench-alarms bench-suspect bench-gates bench-engines bench-gpu bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results assurance traces trace-inputs release clean
+.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect compare-detectors train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-learned-alignment bench-monte-carlo bench-stream bench-fresh bench-suppress bench-robust bench-alarms bench-suspect bench-gates bench-engines bench-gpu bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results assurance traces trace-inputs release clean
 
 # `##@ Title` begins a group of targets; `##` describes a target.
 help: ## list these targets
@@ -364,6 +364,9 @@ bench-monte-carlo: setup-dev # time of 1200 flights of the navigation filter on 
 
 bench-stream: setup-dev # navigator trained on rendered sequences, compared with training on a dataset alone, at equal processor time; writes runs/bench/stream.json
 	@$(BIN)/python -m benchmarks.train.stream
+
+bench-fresh: setup-dev # detector trained on frames rendered during training, compared with stored frames, at equal processor time; writes runs/bench/fresh.json
+	@$(BIN)/python -m benchmarks.train.fresh
 
 bench-suspect: setup-dev # pictures that detect predict suspects not to show the Moon, among lunar pictures and others (MOON=folder OTHERS=folder)
 	@$(BIN)/python -m benchmarks.train.suspect $(call quoted,$(MOON)) --others $(call quoted,$(OTHERS))

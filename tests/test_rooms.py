@@ -34,7 +34,7 @@ ROOMS = {
         "job records work_list report scene_renderer worker local in_process ray_actors run status estimate"
     ),
     "train/perilune_train": (
-        "config compiled data records models training shipped detect motion landing explain report cli"
+        "config compiled records data models training shipped detect motion landing explain report cli"
     ),
     "train/perilune_train/cli": "options detect navigate explain report main",
     "train/perilune_train/detect": (

@@ -206,7 +206,7 @@ def train_witness(run: runs.RunFolder, config: "WitnessConfig", data: Data, over
             return
         splits = data.splits
         task = WitnessTask(build_witness(config), config, splits["train"], splits["val"])
-        task.terrain = training_provenance(data.dataset).plain()
+        task.provenance = training_provenance(data.dataset)
         start_run(run, "detect", config, inputs, state)
         schedule = Schedule(
             config.epochs,

@@ -57,18 +57,20 @@ NETWORK = {
     "learning_rate": 0.002,
     "jitter": 0.3,
 }
-_SCENES = 5000
-_PROGRAM = Path(sys.executable).parent / "perilune-render"
+SCENES = 5000
+"""Number of scenes that a training may use."""
+PROGRAM = Path(sys.executable).parent / "perilune-render"
+"""The command line of the renderer, in the environment of this process."""
 
 
 @contextmanager
-def server(scene: Path, share: float) -> Iterator[tuple[str, int | None]]:
+def server(scene: Path, share: float, kind: str = "nav") -> Iterator[tuple[str, int | None]]:
     """A server in another process: its address and its process id; none is started for a share of 0."""
     if share == 0:
         yield "", None
         return
-    options = ["--preset", "small", "--port", "0", "--native-port", "0", "--scenes", str(_SCENES + 1)]
-    command = [str(_PROGRAM), "serve", "--scene", str(scene), *options]
+    options = ["--preset", "small", "--kind", kind, "--port", "0", "--native-port", "0", "--scenes", str(SCENES + 1)]
+    command = [str(PROGRAM), "serve", "--scene", str(scene), *options]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         try:
@@ -90,7 +92,7 @@ def processor_s(pid: int | None) -> float:
 def settings(seed: int, share: float, epochs: int, address: str) -> NavigateConfig:
     """The settings of one training."""
     network = NETWORK | {"fine_epochs": epochs}
-    stream = {"address": address, "n_scenes": _SCENES, "share": share, "seed": seed, "timeout_s": 600.0}
+    stream = {"address": address, "n_scenes": SCENES, "share": share, "seed": seed, "timeout_s": 600.0}
     return NavigateConfig.model_validate(
         {
             "seed": seed,
@@ -152,7 +154,7 @@ def main() -> None:
     scene.write_text(to_yaml_text({"dataset": DATASET}))
     if not (dataset / "dataset.json").is_file():
         rendering = ["--preset", "small", "--config", str(scene), "--kind", "nav", "--workers", "1"]
-        subprocess.run([str(_PROGRAM), "dataset", *rendering, "--out", str(out / "data")], check=True)
+        subprocess.run([str(PROGRAM), "dataset", *rendering, "--out", str(out / "data")], check=True)
     cases = [(float(share), int(seed)) for seed in arguments.seeds.split(",") for share in arguments.shares.split(",")]
     began = os.getloadavg()[0]
     forked = multiprocessing.get_context("fork")  # imports take longer than a short training

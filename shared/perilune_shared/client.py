@@ -128,6 +128,8 @@ class SceneClient:
         try:
             self._socket.connect(self.address)
         except self._zmq.ZMQError as error:
+            # Garbage collection would wait forever for a context with an open socket.
+            self.close()
             raise UserError("client", "address", f"{self.address} ({error})", "tcp://host:port") from None
 
     def __enter__(self) -> "SceneClient":

@@ -1,6 +1,8 @@
 """The client of the image server against a server of this test: retries, indices, replies that fit no request."""
 
 import json
+import subprocess
+import sys
 import threading
 import time
 
@@ -96,3 +98,18 @@ def test_a_frame_without_an_image_is_an_error_and_has_no_index():
             client.frame((0, 0, 500), DOWN)
         client.frame((0, 0, 500), DOWN)
         assert server.indices == [0, 0]
+
+
+def test_a_refused_address_leaves_nothing_that_blocks():
+    """A garbage collection would wait forever for a context whose socket is still open."""
+    code = """
+import gc
+from perilune_shared.client import SceneClient
+from perilune_shared.errors import UserError
+try:
+    SceneClient("nowhere")
+except UserError as error:
+    error.cycle = error
+gc.collect()
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -1,8 +1,10 @@
-"""Types that the sections `detect`, `navigate` and `explain` share."""
+"""Types and settings that the sections `detect`, `navigate` and `explain` share."""
 
 from typing import Annotated, Literal
 
 from pydantic import Field
+
+from perilune_shared.config.resolve import Section
 
 Attention = Literal["none", "cbam", "cbam_identity", "cbam_centred", "cbam_last"]
 """none: plain Darknet53; cbam: the paper's gates; cbam_identity: gates that are exactly 1 at initialisation;
@@ -23,3 +25,20 @@ Rate = Annotated[float, Field(gt=0, le=1000)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Epochs = Annotated[int, Field(ge=0, le=1_000_000)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
+
+
+class ServerConfig(Section):
+    """Settings of an image server, `perilune-render serve`, that renders samples during training. A sample is a
+    sequence of the navigator or a frame of the detector."""
+
+    address: Annotated[str, Field(min_length=1, max_length=300)]
+    """Address of the server's interface for `perilune_shared.client`, such as tcp://127.0.0.1:10364."""
+    n_scenes: Annotated[int, Field(ge=1, lt=2**31)] = 1000
+    """Number of scenes. Training uses the server's scenes 1 to n_scenes in turn. The server also has a scene 0, so
+    start it with `--scenes` n_scenes + 1."""
+    share: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Fraction of the samples of an epoch that are rendered; the others come from the dataset."""
+    seed: Seed = 0
+    """Random seed of the poses and the noise of rendered samples."""
+    timeout_s: Annotated[float, Field(gt=0, le=100_000)] = 60.0
+    """Longest time to wait for a reply from the server, seconds."""

@@ -53,6 +53,13 @@ def serve(
     idle_s: Annotated[
         float, typer.Option(min=1, help="Time without a request after which a client is disconnected, seconds.")
     ] = 600.0,
+    kind: Annotated[
+        Literal["detect", "nav"],
+        typer.Option(
+            help="Dataset whose descents the ground fits, unless dataset.scene.views is set, and from whose settings"
+            " the Suns of further scenes are drawn."
+        ),
+    ] = "nav",
     scenes: Annotated[
         int,
         typer.Option(min=1, max=2**31, help="Number of scenes from which clients of `perilune_shared.client` choose."),
@@ -76,7 +83,7 @@ def serve(
 
     conventions = Conventions(sun_azimuth, roll, allow_quit)
     limits = Limits(clients=max_clients, idle_s=idle_s)
-    with open_simulation(config) as simulated, Grounds(simulated, scenes, say) as grounds:
+    with open_simulation(config, kind) as simulated, Grounds(simulated, scenes, say, kind) as grounds:
         say("rendering a first frame")
         simulated.prepare()
         start = _start(simulated)

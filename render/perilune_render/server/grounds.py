@@ -22,19 +22,27 @@ MAX_WAITING = 16
 _STREAM = "served"
 
 
-def served_scene(config: DatasetConfig, number: int) -> ScenePlan:
-    """Random seed and Sun of the further scene `number`, from 1; the Sun is drawn from `dataset.nav.sun`.
+def served_scene(config: DatasetConfig, number: int, kind: str = "nav") -> ScenePlan:
+    """Random seed and Sun of the further scene `number`, from 1.
 
-    No scene of a dataset has this seed, so no dataset has this terrain.
+    The Sun is drawn from the settings of the dataset `kind`, such as `dataset.nav.sun`. No scene of a dataset has this
+    seed, so no dataset has this terrain.
     """
-    return drawn_scene(config, config.nav.sun, _STREAM, number)
+    return drawn_scene(config, config.kind(kind).sun, _STREAM, number)
 
 
 class Grounds:
     """The simulated scenes by number. Only the thread that renders may use it. Close it at the end."""
 
-    def __init__(self, first: SimulatedScene, n_scenes: int = 1, note: Callable[[str], object] = lambda text: None):
-        self.first, self.n_scenes, self._note = first, n_scenes, note
+    def __init__(
+        self,
+        first: SimulatedScene,
+        n_scenes: int = 1,
+        note: Callable[[str], object] = lambda text: None,
+        kind: str = "nav",
+    ):
+        """Scene 0 is `first`. The Suns of the other scenes are drawn as in the dataset `kind`, detect or nav."""
+        self.first, self.n_scenes, self._note, self._kind = first, n_scenes, note, kind
         self._in_memory: dict[int, SimulatedScene] = {}
         self._waiting: dict[int, object] = {}
         self._failed: dict[int, Exception] = {}
@@ -111,7 +119,7 @@ class Grounds:
         config, view = self.first.config, self.first.scene.view
         if view is None:
             raise UserError("request", "scene", number, "0: the ground was made for no views")
-        planned = served_scene(config, number)
+        planned = served_scene(config, number, self._kind)
         sun = {"sun_azimuth_deg": planned.sun_azimuth_deg, "sun_elevation_deg": planned.sun_elevation_deg}
         lit = config.model_copy(update={"scene": (config.scene or SceneConfig()).model_copy(update=sun)})
         simulated = SimulatedScene(cached_scene(config, view, planned.seed), lit, self._note)

@@ -193,19 +193,20 @@ def shot_of(
     return Shot(*pose, velocity, seed, index, angular_velocity_radps=turn)
 
 
-def open_simulation(config: DatasetConfig) -> SimulatedScene:
+def open_simulation(config: DatasetConfig, kind: str = "nav") -> SimulatedScene:
     """The simulated scene of a configuration.
 
-    Its ground covers the views in `dataset.scene.views` or, without them, the flights of `dataset.nav`.
+    Its ground covers the views in `dataset.scene.views` or, without them, the flights of the dataset `kind`, detect or
+    nav.
     """
     (mounted_camera,) = rig_of(config).values()
     scene = config.scene or SceneConfig()
     if scene.views:
         view = scene_view(scene, mounted_camera.exr_camera)
     elif scene.horizon:
-        view = horizon_envelope(mounted_camera.exr_camera, config.nav.flight)
+        view = horizon_envelope(mounted_camera.exr_camera, config.ground_flight(kind))
     else:
-        view = view_envelope(mounted_camera.levelled(), config.nav.flight)
+        view = view_envelope(mounted_camera.levelled(), config.ground_flight(kind))
     return simulation_over(config, view, scene_seed(config))
 
 

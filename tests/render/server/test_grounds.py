@@ -7,6 +7,7 @@ import pytest
 from tests.helpers.scenes import config_with
 from tests.render.server.native_running import NativeRunning
 
+from perilune_render.config.values import Span
 from perilune_render.flight.plan import make_plan
 from perilune_render.poses.plan import scene_seed
 from perilune_render.server.grounds import MAX_KEPT, Grounds, served_scene
@@ -43,6 +44,16 @@ def test_no_dataset_has_the_terrain_of_a_further_scene():
         served = {served_scene(config, number).seed for number in range(1, 1000)}
         assert len(served) == 999
         assert not served & (planned | {scene_seed(config)})
+
+
+def test_suns_are_drawn_as_in_the_dataset_of_a_kind():
+    config = config_with(name="some", seed=3)
+    low, high = config.nav.sun, config.nav.sun.model_copy(update={"elevation_deg": Span(low=80.0, high=85.0)})
+    config = config.model_copy(update={"detect": config.detect.model_copy(update={"sun": high})})
+    for number in range(1, 20):
+        of_detect, of_nav = served_scene(config, number, "detect"), served_scene(config, number)
+        assert 80 <= of_detect.sun_elevation_deg <= 85 and of_detect.seed == of_nav.seed
+        assert low.elevation_deg.low <= of_nav.sun_elevation_deg <= low.elevation_deg.high
 
 
 def test_a_prepared_scene_opens_no_engine_for_the_first_client(simulated, monkeypatch):

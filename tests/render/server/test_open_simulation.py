@@ -49,6 +49,19 @@ def test_a_horizon_of_too_high_descents_is_refused():
         open_simulation(config)
 
 
+def test_the_ground_fits_the_descents_of_a_kind():
+    """`detect` starts farther from the site than `nav` here."""
+    config = config_of(None)
+    detect = config.detect.model_copy(update={"flight": config.nav.flight.model_copy(update={"downrange_m": 90.0})})
+    config = config.model_copy(update={"detect": detect})
+    for kind in ("detect", "nav"):
+        view = view_envelope(camera_of(config.camera), config.kind(kind).flight)
+        with open_simulation(config, kind) as simulated:
+            assert simulated.scene.grid.extent_m == graded_grid(config.terrain, view).extent_m
+    with open_simulation(config) as plain, open_simulation(config, "detect") as wider:
+        assert wider.scene.grid.extent_m > plain.scene.grid.extent_m + 50
+
+
 def test_blender_refuses_a_ground_of_which_it_would_show_only_one_descent():
     pytest.importorskip("bpy")
     config = config_of(None)

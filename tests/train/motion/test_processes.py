@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.train.motion import forked
+from tests.helpers import forked
 
 from perilune_shared.errors import UserError
 from perilune_train.motion.config import NavigateConfig

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.train.motion.served import Served
+from tests.helpers.served import Served
 
 from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.manifest import open_dataset

@@ -1,5 +1,6 @@
 """`perilune-train detect`: train, evaluate, find craters in images, export for flight."""
 
+import json
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -80,6 +81,13 @@ def train(
             help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix. [default: data/<preset>/detect]"
         ),
     ] = None,
+    stream_scenes: Annotated[
+        str | None,
+        typer.Option(
+            help="Address tcp://host:port of `perilune-render serve`, which renders the training frames during"
+            " training. Sets detect.fresh.address."
+        ),
+    ] = None,
     runs: RunsFolder = Path("runs"),
     name: RunName = None,
     allow_overlap: AllowOverlap = False,
@@ -93,7 +101,8 @@ def train(
 
     To train the baseline without attention: perilune-train detect train --set detect.attention=none --name small-plain
     """
-    settings = resolve(DetectConfig, "detect", "perilune_train", preset, config, tuple(set_ or ()))
+    own = [*(set_ or ()), *([f"detect.fresh.address={json.dumps(stream_scenes)}"] if stream_scenes is not None else [])]
+    settings = resolve(DetectConfig, "detect", "perilune_train", preset, config, tuple(own))
     # Importing torch and Lightning takes seconds; check the settings first.
     from perilune_train.detect.train.detect_run import run_detect
 

@@ -7,7 +7,19 @@ from pydantic import Field, field_validator, model_validator
 from perilune_shared.config.errors import nearest
 from perilune_shared.config.resolve import Section
 from perilune_shared.labels.thresholds import SELECTIONS, Selection
-from perilune_train.config import Attention, Count, Device, Epochs, Fraction, Precision, Rate, Seed, Strategy, Weight
+from perilune_train.config import (
+    Attention,
+    Count,
+    Device,
+    Epochs,
+    Fraction,
+    Precision,
+    Rate,
+    Seed,
+    ServerConfig,
+    Strategy,
+    Weight,
+)
 
 _Stride = Annotated[int, Field(ge=1, le=1024)]
 COARSEST_STRIDE = 32
@@ -151,6 +163,14 @@ class EvaluationSettings(Section):
     the threshold of the highest F1."""
 
 
+class FreshConfig(ServerConfig):
+    """Settings of training frames over scenes that are not in the dataset. `perilune-render serve` renders and labels
+    them during training."""
+
+    frames_per_scene: Count = 64
+    """Number of consecutive frames that are rendered over one scene, under one Sun, before the next scene."""
+
+
 class DetectConfig(Section):
     """The section `detect`."""
 
@@ -240,6 +260,9 @@ class DetectConfig(Section):
     stream: bool = False
     """Read the training frames of a packed dataset as a stream instead of loading them into memory. The order of
     frames then also depends on `workers`, so do not change it before you resume a run."""
+    fresh: FreshConfig | None = None
+    """Training frames that are rendered during training; requires `stream=false` and `workers=0`. null: frames from the
+    dataset only. `--stream-scenes` sets the address."""
 
     @model_validator(mode="after")
     def _check(self) -> "DetectConfig":
@@ -251,4 +274,6 @@ class DetectConfig(Section):
             raise ValueError("epochs a multiple of validate_every")
         if self.trained == "ellipses" and not (self.ellipses and self.init_from and not self.frozen_epochs):
             raise ValueError("trained=ellipses with ellipses=true, init_from and frozen_epochs=0")
+        if self.fresh is not None and (self.stream or self.workers > 0):
+            raise ValueError("stream=false and workers=0, since fresh is given")
         return self

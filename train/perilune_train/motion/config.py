@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from perilune_shared.config.resolve import Section
-from perilune_train.config import Attention, Count, Device, Epochs, Precision, Rate, Seed, Weight
+from perilune_train.config import Attention, Count, Device, Epochs, Precision, Rate, Seed, ServerConfig, Weight
 
 _Few = Annotated[int, Field(ge=1, le=4096)]
 Target = Literal["motion", "pose"]
@@ -71,23 +71,12 @@ class FusionConfig(Section):
     trajectories from the mean pose of each frame."""
 
 
-class StreamConfig(Section):
+class StreamConfig(ServerConfig):
     """Settings of training sequences over scenes that are not in the dataset. `perilune-render serve` renders them
     during training."""
 
-    address: Annotated[str, Field(min_length=1, max_length=300)]
-    """Address of the server's interface for `perilune_shared.client`, such as tcp://127.0.0.1:10364."""
-    n_scenes: Annotated[int, Field(ge=1, lt=2**31)]
-    """Number of scenes. Training uses the server's scenes 1 to n_scenes in turn. The server also has a scene 0, so
-    start it with `--scenes` n_scenes + 1."""
     pairs_per_scene: Count = 64
     """Number of consecutive pairs that are rendered over one scene before the next scene."""
-    share: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Fraction of the sequences of an epoch that are rendered; the others come from the dataset."""
-    seed: Seed = 0
-    """Random seed of the poses and the noise of rendered sequences."""
-    timeout_s: Annotated[float, Field(gt=0, le=100_000)] = 60.0
-    """Longest time to wait for a reply from the server, seconds."""
 
 
 class NavigateConfig(Section):
@@ -122,7 +111,7 @@ class NavigateConfig(Section):
     cores."""
     stream: StreamConfig | None = None
     """Training sequences that are rendered during training; requires `fusion=warp` and `workers=0`. null: sequences
-    from the dataset only. (`detect.stream` is another setting: it reads a dataset in portions.)"""
+    from the dataset only. The detector's counterpart is `detect.fresh`; `detect.stream` reads a dataset in portions."""
     warp: FusionConfig
     """Network with the later frame warped by the nominal motion and both frames stacked in channels."""
     stack: FusionConfig

@@ -25,7 +25,7 @@ Hashes = Mapping[str, str | None]
 
 _NO_EFFECT_ON_RESULT = {
     f"{task}.{setting}" for task in ("detect", "navigate") for setting in ("workers", "checkpoint_minutes")
-} | {"navigate.stream.address", "navigate.stream.timeout_s"}
+} | {f"{server}.{setting}" for server in ("detect.fresh", "navigate.stream") for setting in ("address", "timeout_s")}
 """Settings that change how a run proceeds, but not its result."""
 _REPLACE = "; --overwrite replaces the run"
 _STATE_KEY = "perilune/run"

@@ -14,6 +14,7 @@ from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.assign import BatchLabels, Targets, assign
 from perilune_train.detect.data.augment import augment
+from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.training.runs import choose_device
 
@@ -22,8 +23,8 @@ Sample = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
 """A normalised frame (H, W), its outlines (M, 5, see augment.py), and whether each crater is selected (M,)."""
 Batch = tuple[Tensor, Targets]
 """Normalised frames (N, H, W) and the assignments of their labels; outside training the assignments are empty."""
-Key = tuple[int, int]
-"""Epoch, and number of a frame within one process's share of the split."""
+Key = tuple[int, ...]
+"""Epoch, and number of a frame within one process's share of the split; further numbers belong to subclasses."""
 
 
 class TrainingFrames(torch_data.Dataset):
@@ -35,20 +36,30 @@ class TrainingFrames(torch_data.Dataset):
     def __init__(self, split: DetectSplit, config: DetectConfig):
         self.split, self.settings, self.seed = split, config.augment, config.seed
 
-    def keys(self, epoch: int) -> list[Key]:
-        """Keys of the share's frames in the order of an epoch, which depends on seed and epoch only."""
+    def order(self, epoch: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Numbers (n,) of the share's frames in the order of an epoch, which depends on seed and epoch only.
+
+        Also returns their positions (n,) in the order of all frames of the split.
+        """
         order = np.random.default_rng([self.seed, epoch]).permutation(self.split.n_frames)
-        numbers = order[self.split.share.owns(order)] // self.split.share.processes
-        return [(epoch, int(number)) for number in numbers]
+        positions = np.flatnonzero(self.split.share.owns(order))
+        return order[positions] // self.split.share.processes, positions
+
+    def keys(self, epoch: int) -> list[Key]:
+        """Keys of the share's frames in the order of an epoch."""
+        return [(epoch, int(number)) for number in self.order(epoch)[0]]
 
     def __getitem__(self, key: Key) -> Sample:
-        epoch, number = key
-        split, labels = self.split, self.split.labels[number]
-        in_split = split.share.of(split.n_frames)[number]
+        return self.augmented(key, self.split.frames.images[key[1]], self.split.labels[key[1]])
+
+    def augmented(self, key: Key, image: NDArray[np.uint8], labels: FrameLabels) -> Sample:
+        """An image with its labels, with the augmentation that belongs to the key."""
+        epoch, number = key[:2]
+        in_split = self.split.share.of(self.split.n_frames)[number]
         rng = np.random.default_rng([self.seed, epoch, in_split])
-        image = split.frames.images[number]
-        outlines = labels.outlines
-        pixels, outlines, selected = augment(image, outlines, labels.selected, split.radius_px, self.settings, rng)
+        pixels, outlines, selected = augment(
+            image, labels.outlines, labels.selected, self.split.radius_px, self.settings, rng
+        )
         return normalised(pixels), outlines, selected
 
 
@@ -110,8 +121,14 @@ def training_loader(
     processes have equally many batches, so up to processes - 1 frames are left out of an epoch; these frames differ
     from epoch to epoch. All other frames are used once.
     """
-    frames = TrainingFrames(split, config)
-    fewest = split.n_frames // split.share.processes
+    return frames_loader(TrainingFrames(split, config), config, anchors, epoch, start)
+
+
+def frames_loader(
+    frames: TrainingFrames, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
+) -> torch_data.DataLoader:
+    """Training batches of `frames`, as from `training_loader`."""
+    fewest = frames.split.n_frames // frames.split.share.processes
     batches = EpochBatches(frames.keys, fewest, config.batch_size, epoch, start)
     return batch_loader(frames, batches, collate_of(config, anchors), config.workers, pinned(config))
 

@@ -21,6 +21,8 @@ _VARIES = 10.0
 """Largest ratio of a lens model's scale to the scale of a crater's image, which is also smaller if seen obliquely."""
 _CENTRE, _NORMAL = ["x_m", "y_m", "z_m"], ["normal_x", "normal_y", "normal_z"]
 _SIZE = ["diameter_m", "depth_m"]
+CRATER_COLUMNS = ["crater_id", *_CENTRE, *_NORMAL, *_SIZE]
+"""Columns of the table `craters` that `craters_of` needs."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,12 @@ class Craters:
 
 def read_craters(dataset: Dataset, scene_id: str) -> Craters:
     """Read the craters of one scene."""
-    table = dataset.table("craters", ["crater_id", *_CENTRE, *_NORMAL, *_SIZE], scene_id=scene_id).sort_by("crater_id")
+    return craters_of(dataset.table("craters", CRATER_COLUMNS, scene_id=scene_id))
+
+
+def craters_of(table: pa.Table) -> Craters:
+    """The craters of one scene from their rows of the table `craters`, in any order."""
+    table = table.sort_by("crater_id")
     sizes = (_real(table[name]) for name in _SIZE)
     return Craters(table["crater_id"].to_numpy(), _vectors(table, _CENTRE), _vectors(table, _NORMAL), *sizes)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from perilune_shared.dataset.keys import FRAME_COLUMNS, KeyCheck
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
 from perilune_shared.labels.selection import selected
 from perilune_shared.labels.thresholds import Selection
 from perilune_train.data.shares import Share
@@ -23,8 +24,9 @@ Array = NDArray[np.float64]
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
 _SHAPE = [*_BOX, "radius_px", *_ELLIPSE]
-_KEYS = ["frame_id", "crater_id"]
 _THRESHOLDED = ["radius_px", "visible_fraction", "sunlit_fraction", "contrast"]
+LABEL_COLUMNS = list(dict.fromkeys(["crater_id", *_THRESHOLDED, *_SHAPE]))
+"""Columns of the table `labels` that `frame_labels` needs."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ def read_split_labels(
         .fill_null(-1)
         .to_numpy()
     )
-    names = list(dict.fromkeys([*_KEYS, *_THRESHOLDED, *_SHAPE]))
+    names = ["frame_id", *LABEL_COLUMNS]
     frames, sizes, share_frames = _Joined(), [], share.of(len(table))
     with dataset.parts_kept_open():
         for scene_id, scene_frames in table.groupby("scene_id").indices.items():
@@ -158,7 +160,8 @@ def read_split_labels(
 
 
 def frame_labels(
-    dataset: Dataset,
+    where: object,
+    camera: Camera,
     row: dict[str, Any],
     labels: pa.Table,
     craters: Craters,
@@ -167,15 +170,15 @@ def frame_labels(
     """Labels and ignored craters of one frame.
 
     `row` is the frame's row of the table `frames`, `labels` its rows of the table `labels`, and `craters` the craters
-    of its scene. Raises UserError if the crater of a label is missing.
+    of its scene. Raises UserError about `where` if the crater of a label is missing.
     """
     ids = labels["crater_id"].to_numpy()
     known = (np.append(craters.crater_id, -1)[np.searchsorted(craters.crater_id, ids)] == ids) & (ids >= 0)
     if not known.all():
         got = f"{ids[known.argmin()]} in {row['frame_id']}"
-        raise UserError(dataset.store, "labels: crater_id", got, "craters; see `perilune-manifest validate`")
+        raise UserError(where, "labels: crater_id", got, "craters; see `perilune-manifest validate`")
     scene_labels = _SceneLabels.of(labels, craters, limits.selection)
-    ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, scene_labels.crater_id)
+    ignored = unlabelled_craters(craters, camera, row, limits.radius_px, limits.zoom, scene_labels.crater_id)
     frames = _Joined()
     frames.add(scene_labels, ignored)
     return frames.joined()[0]

@@ -15,7 +15,7 @@ from torch.utils import data as torch_data
 from perilune_train.data.epochs import EpochBatches, batch_loader
 from perilune_train.detect.config import AugmentSettings, DetectConfig
 from perilune_train.detect.data.assign import Assignment, Targets, assign
-from perilune_train.detect.data.batches import TrainingFrames, batch_labels
+from perilune_train.detect.data.batches import Key, TrainingFrames, batch_labels
 from perilune_train.detect.data.split import DetectSplit
 
 _UNCHANGED = AugmentSettings(
@@ -113,11 +113,11 @@ def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
 def may_reside(config: DetectConfig) -> bool:
     """Whether the settings allow resident frames.
 
-    They need a single process, and no augmentation, teacher, guidance loss or stream.
+    They need a single process, and no augmentation, teacher, guidance loss, stream or rendered frames.
     """
     alone = config.devices == config.num_nodes == 1
     plain = config.teacher is None and config.loss.lambda_guide == 0
-    return alone and plain and not config.stream and config.augment == _UNCHANGED
+    return alone and plain and not config.stream and config.fresh is None and config.augment == _UNCHANGED
 
 
 def fits(split: DetectSplit, device: torch.device) -> bool:
@@ -128,7 +128,7 @@ def fits(split: DetectSplit, device: torch.device) -> bool:
 class _Numbers(torch_data.Dataset):
     """A dataset whose items are the numbers of the frames."""
 
-    def __getitem__(self, key: tuple[int, int]) -> int:
+    def __getitem__(self, key: Key) -> int:
         return key[1]
 
 

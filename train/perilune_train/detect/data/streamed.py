@@ -90,7 +90,7 @@ class _Labels:
         self.scenes[scene_id] = craters
         labels = pa.Table.from_struct_array(frame.labels)
         limits = LabelLimits(self.config.labels, self.radius_px, self.config.augment.scale)
-        return frame_labels(self.dataset, frame.row, labels, craters, limits)
+        return frame_labels(self.dataset.store, self.dataset.camera, frame.row, labels, craters, limits)
 
 
 @dataclass(frozen=True)

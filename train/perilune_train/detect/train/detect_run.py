@@ -1,5 +1,6 @@
 """One training run of the detector: load, train, evaluate, write."""
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 from perilune_train.data.shares import ALONE
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.fresh import FreshFrames, FreshServer
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.data.streamed import open_streamed
 from perilune_train.detect.evaluate.matching import EDGE
@@ -91,6 +93,7 @@ def _run(
     device = runs.choose_device(config.device)
     scale = {"train": config.augment.scale, "val": (1.0, 1.0), "test": (1.0, 1 / EDGE)}
     share = own_share(config.devices, config.num_nodes)
+    server = FreshServer(config.fresh, dataset) if config.fresh is not None else None
     in_memory = ("val",) if config.stream else ("train", "val")
     splits = {name: load_split(dataset, name, config.labels, scale[name], share) for name in in_memory}
     train = open_streamed(dataset, config, share) if config.stream else splits["train"]
@@ -110,8 +113,9 @@ def _run(
     # A resumed run later loads anchors from its state, which may differ from these anchors.
     if not resume:
         say_page(anchor_report(network, sizes, config.anchor_ratio))
-    task = DetectTask(network, config, train, splits["val"], frozen_epochs, teacher)
-    task.terrain = terrain.plain()
+    used = train if server is None else FreshFrames(splits["train"], config, dataset, server)
+    task = DetectTask(network, config, used, splits["val"], frozen_epochs, teacher)
+    task.provenance = terrain
     schedule = Schedule(
         epochs=config.epochs,
         # AP does not depend on the ellipses: keep the last weights.
@@ -125,7 +129,8 @@ def _run(
     strategy = "ddp_find_unused_parameters_true" if config.strategy == "auto" and frozen_epochs else config.strategy
     hardware = Hardware(device, config.devices, config.num_nodes, strategy, config.precision)
     wording = Wording("train detector", f"detect.learning_rate, which is {config.learning_rate:g}")
-    seconds = fit(run, task, schedule, hardware, wording, resume)
+    with closing(task):
+        seconds = fit(run, task, schedule, hardware, wording, resume)
     if not runs.is_first_process():
         return run
     if share != ALONE:

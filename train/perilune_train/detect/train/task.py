@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.assign import Targets
-from perilune_train.detect.data.batches import Batch, evaluation_loader, network_input, training_loader
+from perilune_train.detect.data.batches import Batch, evaluation_loader, frames_loader, network_input, training_loader
+from perilune_train.detect.data.fresh import FreshFrames
 from perilune_train.detect.data.resident import ResidentFrames, fits, may_reside, resident_loader
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.data.streamed import StreamedSplit, streamed_loader
@@ -25,7 +26,7 @@ from perilune_train.detect.train.guide import guide_loss
 from perilune_train.detect.train.loss import detection_loss
 from perilune_train.detect.train.preview_images import preview_images
 from perilune_train.models.yolo import YOLOv3
-from perilune_train.records.provenance import RECORD
+from perilune_train.records.provenance import RECORD, Provenance
 
 _FINAL_RATE = 0.01
 _EVERY_STEP_UNTIL = 100
@@ -82,7 +83,7 @@ class DetectTask(lightning.LightningModule):
         self,
         network: YOLOv3,
         config: DetectConfig,
-        train: DetectSplit | StreamedSplit,
+        train: DetectSplit | StreamedSplit | FreshFrames,
         val: DetectSplit,
         frozen_epochs: int,
         teacher: Teacher | None = None,
@@ -104,7 +105,7 @@ class DetectTask(lightning.LightningModule):
         self.train_split, self.val_split = train, val
         self.detections: list[Detections] = []
         self.images_seen = 0
-        self.terrain: dict[str, Any] | None = None
+        self.provenance: Provenance | None = None
         self.resumed = (0, 0)
         self.resident: ResidentFrames | None = None
         self.captured: CapturedStep | None = None
@@ -122,9 +123,22 @@ class DetectTask(lightning.LightningModule):
         return self.network.ellipse_tower
 
     @property
+    def terrain(self) -> dict[str, Any] | None:
+        """The record of the training terrain as plain data, including all terrain that was rendered so far."""
+        if self.provenance is None:
+            return None
+        fresh = self.train_split if isinstance(self.train_split, FreshFrames) else None
+        return self.provenance.joined([Provenance(fresh.server.uses)] if fresh else []).plain()
+
+    def close(self) -> None:
+        """Stop the thread that renders frames."""
+        if isinstance(self.train_split, FreshFrames):
+            self.train_split.close()
+
+    @property
     def resides(self) -> bool:
         """Whether the training frames are kept on the device, and steps are captured."""
-        if self.device.type != "cuda" or isinstance(self.train_split, StreamedSplit):
+        if self.device.type != "cuda" or not isinstance(self.train_split, DetectSplit):
             return False
         return may_reside(self.config) and fits(self.train_split, self.device)
 
@@ -136,6 +150,8 @@ class DetectTask(lightning.LightningModule):
         split, anchors = self.train_split, self.network.anchors
         if isinstance(split, StreamedSplit):
             return streamed_loader(split, self.config, anchors, epoch, start)
+        if isinstance(split, FreshFrames):
+            return frames_loader(split, self.config, anchors, epoch, start)
         if self.resides:
             return resident_loader(split, self.config, epoch, start)
         return training_loader(split, self.config, anchors, epoch, start)
@@ -151,6 +167,9 @@ class DetectTask(lightning.LightningModule):
         checkpoint["images_seen"] = self.images_seen
         if isinstance(self.train_split, StreamedSplit):
             checkpoint["stream"] = self.train_split.stream.state_dict()
+        if isinstance(self.train_split, FreshFrames):
+            self.train_split.server.join_records(self.process[1])
+            checkpoint["fresh"] = self.train_split.server.state_dict()
         if self.terrain is not None:
             checkpoint[RECORD] = self.terrain
 
@@ -159,6 +178,8 @@ class DetectTask(lightning.LightningModule):
         self.resumed = (epoch, batches)
         if isinstance(self.train_split, StreamedSplit):
             self.train_split.stream.load_state_dict(checkpoint["stream"])
+        if isinstance(self.train_split, FreshFrames):
+            self.train_split.server.load_state_dict(checkpoint["fresh"])
         self.images_seen = checkpoint.get("images_seen", 0)
 
     def configure_optimizers(self) -> Any:
@@ -320,6 +341,8 @@ class DetectTask(lightning.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         self.detections = []
+        if isinstance(self.train_split, FreshFrames):
+            self.train_split.server.join_records(self.process[1])
         if self.process[1] > 1:
             # Weights are equal in all processes, but batch statistics differ: use the statistics of the first process.
             for value in self.evaluated.buffers():

@@ -8,14 +8,12 @@ the azimuth, which is uniform.
 
 from collections.abc import Iterator
 from dataclasses import replace
-from math import floor
 from typing import Any
 
 import numpy as np
 
-from perilune_shared.errors import UserError
-from perilune_train.data.epochs import DataLost
-from perilune_train.motion.data.ahead import Ahead
+from perilune_train.data.ahead import Ahead
+from perilune_train.data.image_server import resumable
 from perilune_train.motion.data.epochs import Key, TrainingSequences
 from perilune_train.motion.data.sequences import Sequence
 from perilune_train.motion.data.stream import Stream
@@ -47,17 +45,15 @@ class StreamedSequences(TrainingSequences):
 
     def is_rendered(self, key: Key) -> bool:
         """Whether a sequence is rendered. Rendered sequences are spread evenly over an epoch."""
-        share = self.stream.settings.share
-        return floor((key[1] + 1) * share) > floor(key[1] * share)
+        return self.stream.is_rendered(key[1])
 
     def scene_of(self, key: Key) -> int:
         """Number, from 1, of the server's scene that a rendered sequence shows.
 
         The scene changes after about `pairs_per_scene` pairs; after the last scene comes the first again.
         """
-        settings = self.stream.settings
-        before = key[0] * floor(sum(self.counts) * settings.share) + floor(key[1] * settings.share)
-        return 1 + before * self.n_pairs // settings.pairs_per_scene % settings.n_scenes
+        before = self.stream.n_before(key[0], key[1], sum(self.counts))
+        return self.stream.scene_of(before * self.n_pairs // self.stream.settings.pairs_per_scene)
 
     def poses(self, key: Key) -> tuple[Trajectory, np.ndarray, int]:
         """Poses of a rendered sequence, without images; velocities (n, 3), m/s, O_L; first index of the noise."""
@@ -87,16 +83,8 @@ class StreamedSequences(TrainingSequences):
 
     def _render(self, keys: Iterator[Key]) -> Iterator[tuple[Key, Sequence]]:
         """Render sequences. Raises DataLost if the server fails."""
-        try:
-            with self.stream.client() as client:
-                for key in keys:
-                    part, velocity, index = self.poses(key)
-                    scene = self.scene_of(key)
-                    following = scene % self.stream.settings.n_scenes + 1
-                    rendered = self.stream.rendered(
-                        client, scene, following if following != scene else None, part, velocity, index
-                    )
-                    yield key, self.augmented_sequence(key, rendered.shrunk(self.size_px), 0)
-        except UserError as error:
-            expected = f"{error.expected}; then run the same command again to resume"
-            raise DataLost(error.where, error.field, error.found, expected) from None
+        with resumable(), self.stream.client() as client:
+            for key in keys:
+                part, velocity, index = self.poses(key)
+                rendered = self.stream.rendered(client, self.scene_of(key), part, velocity, index)
+                yield key, self.augmented_sequence(key, rendered.shrunk(self.size_px), 0)

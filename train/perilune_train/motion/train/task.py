@@ -227,6 +227,7 @@ class NavigationTask(lightning.LightningModule):
         done = self.trainer.fit_loop.epoch_loop.batch_progress.current.processed
         checkpoint["epoch_and_batches"] = [self.current_epoch, done]
         if self.stream is not None:
+            self.stream.join_records(self.share.processes)
             checkpoint["streamed"] = self.stream.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -317,6 +318,8 @@ class NavigationTask(lightning.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         self.validation_motions: list[Motion | Pose] = []
+        if self.stream is not None:
+            self.stream.join_records(self.share.processes)
         if self.share.processes > 1:
             # Weights are equal in all processes, but batch statistics differ. Use the statistics of the first process.
             for value in self.network.buffers():

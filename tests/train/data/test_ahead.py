@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from perilune_train.motion.data.ahead import Ahead
+from perilune_train.data.ahead import Ahead
 
 
 def numbers(key):

@@ -1,4 +1,4 @@
-"""A server in another process whose scenes fit the drawn navigation dataset: same camera, same descents."""
+"""A server in another process whose scenes fit the drawn datasets: same camera, same descents."""
 
 import re
 import subprocess
@@ -18,13 +18,16 @@ _SETTINGS = {
 
 
 class Served:
-    """A server at `address` until `stop`; the test is skipped without the renderer or the client."""
+    """A server at `address` until `stop`; the test is skipped without the renderer or the client.
 
-    def __init__(self, folder: Path, n_scenes: int = 5):
+    `changes` are sections of the settings of the scene to replace.
+    """
+
+    def __init__(self, folder: Path, n_scenes: int = 5, **changes: dict):
         pytest.importorskip("perilune_render", reason="needs the image server of the renderer")
         pytest.importorskip("zmq", reason="needs the extra `client`")
         path = folder / "scene.yaml"
-        path.write_text(yaml.safe_dump({"dataset": _SETTINGS}))
+        path.write_text(yaml.safe_dump({"dataset": _SETTINGS | changes}))
         program = Path(sys.executable).parent / "perilune-render"
         options = ["--preset", "tiny", "--port", "0", "--native-port", "0", "--scenes", str(n_scenes)]
         command = [str(program), "serve", "--scene", str(path), *options]
