@@ -44,7 +44,7 @@ SHIPPED, PAGES = ROOT / "train/perilune_train/shipped", ROOT / "docs/reference/m
 MAX_MIB = {"crater-detector": 8.0}
 """Largest size of the weights, MiB. Every clone and every wheel contains the weights."""
 MANIFESTS = {"crater-detector": ("shipped-detect", "oblique-detect")}
-"""Shared manifests of the training data; the second only of the ellipses."""
+"""Shared manifests of the training data; the second is only for ellipses."""
 
 Name = Annotated[str, typer.Option(help="crater-detector.")]
 app = typer.Typer(pretty_exceptions_enable=False, add_completion=False, no_args_is_help=True)
