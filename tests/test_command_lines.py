@@ -135,8 +135,10 @@ def test_commands_about_one_dataset_share_one_kind_by_default():
     }
     one = kinds["plan"]
     assert one[0] == "detect" and kinds["preview"] == kinds["ground"] == one
-    # `dataset` makes both datasets of a preset; poses that a user gives are a path, as of navigation.
-    assert {name: kind[0] for name, kind in kinds.items() if kind != one} == {"dataset": "both", "frames": "nav"}
+    # `dataset` makes both datasets of a preset; poses that a user gives are a path, as of navigation, and so are the poses
+    # of most clients of a server.
+    others = {name: kind[0] for name, kind in kinds.items() if kind != one}
+    assert others == {"dataset": "both", "frames": "nav", "serve": "nav"}
 
 
 MISTAKES = [
@@ -154,7 +156,7 @@ MISTAKES = [
     (
         "perilune-manifest",
         "export x --format foo",
-        "error: --format: got foo, expected one of coco, yolo, tum, kitti, croissant, huggingface",
+        "error: --format: got foo, expected one of coco, yolo, tum, kitti, croissant, huggingface, mcap, rerun",
     ),
     ("perilune-manifest", "-x", "error: no such option -x; see `perilune-manifest --help`"),
     ("perilune-manifest", "valdate x", "error: no such command valdate; did you mean validate?"),

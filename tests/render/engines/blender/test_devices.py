@@ -1,6 +1,5 @@
 """Devices of Cycles. A machine with a GPU skips the tests of the GPU's types."""
 
-import bpy
 import pytest
 from tests.helpers import in_process
 from tests.helpers.scenes import config_with
@@ -8,7 +7,7 @@ from tests.helpers.scenes import config_with
 from perilune_render.cli.main import main
 from perilune_render.config.dataset import RenderConfig
 from perilune_render.dataset.regenerate import _on_this_machine
-from perilune_render.engines.blender.devices import check_device, use_device
+from perilune_render.engines.blender.devices import bpy, check_device, use_device
 from perilune_shared.errors import UserError
 
 TYPES = ("cuda", "optix", "hip", "oneapi", "metal")
