@@ -135,8 +135,7 @@ def test_commands_about_one_dataset_share_one_kind_by_default():
     }
     one = kinds["plan"]
     assert one[0] == "detect" and kinds["preview"] == kinds["ground"] == one
-    # `dataset` makes both datasets of a preset; poses that a user gives are a path, as of navigation, and so are the poses
-    # of most clients of a server.
+    # `dataset` makes both datasets of a preset. Poses that a user or a client gives are a path, as of navigation.
     others = {name: kind[0] for name, kind in kinds.items() if kind != one}
     assert others == {"dataset": "both", "frames": "nav", "serve": "nav"}
 
