@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect compare-detectors train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-learned-alignment bench-monte-carlo bench-stream bench-fresh bench-suppress bench-robust bench-alarms bench-suspect bench-gates bench-engines bench-gpu bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results assurance traces trace-inputs release clean
+.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect compare-detectors train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-lens-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-learned-alignment bench-monte-carlo bench-stream bench-fresh bench-suppress bench-robust bench-alarms bench-suspect bench-gates bench-engines bench-gpu bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results assurance traces trace-inputs release clean
 
 # `##@ Title` begins a group of targets; `##` describes a target.
 help: ## list these targets
@@ -298,6 +298,9 @@ bench-same-bytes: setup-dev # hash of every stage of a frame, to find where two 
 
 bench-labels: setup-dev # label ellipses, compared with rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
 	@$(BIN)/python -m benchmarks.scene.labels --picture docs/pictures/labels_histogram.png
+
+bench-lens-labels: setup-dev # label ellipses under lens models of 180 degrees, compared with projected rims; writes runs/bench/lens_labels.json
+	@$(BIN)/python -m benchmarks.scene.lens_labels
 
 bench-truth: setup-dev # depth and normals of EXRs, compared with cast rays; writes runs/bench/truth.json
 	@$(BIN)/python -m benchmarks.scene.truth

@@ -68,13 +68,13 @@ def _facts(shipment: Shipment, network: str) -> list[str]:
 
 
 def _ellipses(shipment: Shipment) -> str:
-    """Text on the heads of the ellipses; empty if there are none."""
+    """Text on the ellipses; empty if there are none."""
     if not shipment.content["architecture"].get("ellipses"):
         return ""
     commit = str(shipment.metrics.get("ellipses/run/commit", "unknown"))[:7]
     score = _figure(shipment.figures, "visible/ellipse_score")
     return (
-        "centre, semi-axes, direction and standard deviations; the heads were trained alone on top of the other "
+        "centre, semi-axes, direction and standard deviations; the tower was trained alone on top of the other "
         f"weights, commit {commit}. NASA's score on the locked benchmark, labels `visible`: {score} of 100"
     )
 

@@ -8,7 +8,7 @@
 `install` writes train/perilune_train/shipped/NAME/ with weights.safetensors, config.yaml, metrics.json and novelty.json
 (features of the training frames; `perilune-train detect calibrate` adds it to a run without it). The weights are stored
 in half precision, or with `--eight-bits` in half of this size; use `--eight-bits` only if the AP on the validation
-split does not fall. `add-ellipses` adds heads that were trained on top of the installed network with
+split does not fall. `add-ellipses` adds the tower of ellipses that was trained on top of the installed network with
 `detect.trained=ellipses`; boxes and scores stay as they are. The benchmark scores the weights as they are stored.
 `card` adds benchmark.json and card.md to the folder, and writes docs/reference/models/NAME.md, a copy of the card, and
 NAME-benchmark.md, the page of the benchmark.
@@ -77,7 +77,7 @@ def add_ellipses(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run with detect.trained=ellipses.")],
     name: Name,
 ) -> None:
-    """Add the heads of the ellipses of a run to the installed network from which the run started.
+    """Add the tower of ellipses of a run to the installed network from which the run started.
 
     Metrics of the run go into metrics.json with the prefix `ellipses/`.
     """
@@ -90,7 +90,9 @@ def add_ellipses(
     ]
     if other or not content["architecture"].get("ellipses"):
         found = f"{len(other)} other weights changed" if other else "no ellipses"
-        raise UserError(run, "weights", found, f"the weights of {name} and heads of ellipses: detect.trained=ellipses")
+        raise UserError(
+            run, "weights", found, f"the weights of {name} and a tower of ellipses: detect.trained=ellipses"
+        )
     size = _write_weights(folder, content, precision_of(folder / WEIGHTS) != "half precision")
     public = {
         f"ellipses/{key}": value

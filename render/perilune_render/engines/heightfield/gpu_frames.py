@@ -403,10 +403,8 @@ class CudaSource:
             )
         )
         matrices = [
-            image_from_rim(
-                circles, camera, *shot.pose, self._engine.sun, np.searchsorted(circles.crater_id, each.crater_id)
-            )
-            for shot, each in zip(shots, labels, strict=True)
+            image_from_rim(circles, camera, *shot.pose, self._engine.sun, some)
+            for shot, some in zip(shots, rows, strict=True)
         ]
         shapes = ellipses.cx_px, ellipses.cy_px, ellipses.a_px, ellipses.b_px, ellipses.theta_rad
         rims = rims_of(circles, np.concatenate(rows))
