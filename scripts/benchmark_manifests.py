@@ -72,7 +72,8 @@ def plan(kind: str, part: str, n_scenes: int, out: Path, settings: dict[str, obj
     pairs = [text for key, value in chosen.items() for text in ("--set", f"{key}={value}")]
     program, folder = Path(sys.executable).with_name("perilune-render"), out / f"benchmark-{kind}-{part}"
     command = [program, "plan", "--preset", "large", "--kind", kind, *options, *pairs, "--out", folder]
-    subprocess.run(list(map(str, command)), check=True)
+    # In a process group of its own, so that at Ctrl-C only this program prints a line.
+    subprocess.run(list(map(str, command)), check=True, process_group=0)
 
 
 def main(

@@ -14,6 +14,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 
@@ -63,4 +64,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command_line(one_command(main))

@@ -3,8 +3,8 @@
 python scripts/draw_hazard.py data/hazard/nav scene-0000/trajectory-0000/000004
 """
 
-import sys
 from pathlib import Path
+from typing import Annotated
 
 from perilune_shared.console.interrupts import end_at_interrupt
 
@@ -19,12 +19,17 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import rasterio
+import typer
 
 from perilune_render.imaging.exr import read_exr
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.dataset.manifest import open_dataset
 
 
-def main(folder: Path, frame_id: str) -> None:
+def main(
+    folder: Annotated[Path, typer.Argument(help="Dataset with hazard maps and flash lidar.", show_default=False)],
+    frame_id: Annotated[str, typer.Argument(help="Frame of the dataset.", show_default=False)],
+) -> None:
     """Write docs/pictures/hazard.jpg from a frame of a dataset with hazard maps and flash lidar."""
     dataset = open_dataset(folder)
     row = next(row for row in dataset.table("frames").to_pylist() if row["frame_id"] == frame_id)
@@ -59,4 +64,4 @@ def main(folder: Path, frame_id: str) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2])
+    run_command_line(one_command(main))

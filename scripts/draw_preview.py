@@ -13,6 +13,7 @@ import perilune_render.provenance.processor  # noqa: F401, I001 - must be import
 import cv2
 
 from perilune_render.cli.main import app
+from perilune_shared.console.command_line import one_command, run_command_line
 
 PICTURE = Path(__file__).parent.parent / "docs/pictures/small_preview.jpg"
 WIDTH_PX = 1280
@@ -30,4 +31,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command_line(one_command(main))

@@ -71,7 +71,9 @@ def photograph(page: Path, picture: Path) -> None:
 
 
 def _run(program: str, *arguments: object) -> None:
-    subprocess.run([str(Path(sys.executable).parent / program), *map(str, arguments)], check=True)
+    # In a process group of its own, so that at Ctrl-C only this program prints a line.
+    command = [str(Path(sys.executable).parent / program), *map(str, arguments)]
+    subprocess.run(command, check=True, process_group=0)
 
 
 if __name__ == "__main__":

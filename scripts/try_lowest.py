@@ -10,6 +10,7 @@ import pkgutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Annotated
 
 from perilune_shared.console.interrupts import end_at_interrupt
 
@@ -17,8 +18,11 @@ if __name__ == "__main__":
     # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
+import typer
+
 import perilune_shared
 import perilune_train
+from perilune_shared.console.command_line import one_command, run_command_line
 
 ROOT = Path(__file__).resolve().parents[1]
 _OPTIONAL = {"rasterio", "onnx", "onnxruntime", "openvino", "datasets"}
@@ -38,8 +42,10 @@ def import_all() -> int:
     return count
 
 
-def main(folder: Path) -> None:
-    """Print each completed step; raise if a step fails."""
+def main(
+    folder: Annotated[Path, typer.Argument(help="Empty folder for datasets and runs.", show_default=False)],
+) -> None:
+    """Import every module, train one epoch of `tiny`, and find craters; raise if a step fails."""
     print(f"imported {import_all()} modules")
     sys.path.insert(0, str(ROOT))
     from tests.helpers.drawn_dataset import build_dataset
@@ -53,11 +59,13 @@ def main(folder: Path) -> None:
         ["detect", "train", *common, "--dataset", str(folder / "detect"), "--set", "detect.epochs=1"],
         ["navigate", "train", *common, "--dataset", str(folder / "nav"), "--set", "navigate.warp.fine_epochs=0"],
     ):
-        subprocess.run([program, *command], check=True)
+        # In a process group of its own, so that at Ctrl-C only this program prints a line.
+        subprocess.run([program, *command], check=True, process_group=0)
     picture = next((folder / "detect" / "frames").rglob("*.png"))
     run = ["--run", str(folder / "runs" / "detect" / "tiny")]
-    subprocess.run([program, "detect", "predict", str(picture), *run, "--out", str(folder / "craters")], check=True)
+    command = [program, "detect", "predict", str(picture), *run, "--out", str(folder / "craters")]
+    subprocess.run(command, check=True, process_group=0)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    run_command_line(one_command(main))

@@ -8,6 +8,7 @@ FOLDER is an empty folder. scripts/test-wheels uses this program in environments
 import subprocess
 import sys
 from pathlib import Path
+from typing import Annotated
 
 from perilune_shared.console.interrupts import end_at_interrupt
 
@@ -15,7 +16,10 @@ if __name__ == "__main__":
     # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
+import typer
+
 from perilune_shared.client import SceneClient
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.validation.validate import validate
 
@@ -26,9 +30,18 @@ _SMALL = [
 _HEIGHTFIELD = "--set=dataset.render.engine=heightfield"
 
 
+def main(folder: Annotated[Path, typer.Argument(help="Empty folder for the dataset.", show_default=False)]) -> None:
+    """Render a small dataset, serve one frame of its scene, and ask for the engine `cycles`."""
+    render(folder / "dataset")
+    serve()
+    refuse(folder / "cycles")
+
+
 def render(folder: Path) -> None:
     """Render a dataset and validate it."""
-    subprocess.run([_program(), "dataset", *_SMALL, _HEIGHTFIELD, "--kind", "detect", "--out", folder], check=True)
+    command = [_program(), "dataset", *_SMALL, _HEIGHTFIELD, "--kind", "detect", "--out", folder]
+    # In a process group of its own, so that at Ctrl-C only this program prints a line.
+    subprocess.run(command, check=True, process_group=0)
     made = open_dataset(folder / "detect")
     if (faults := validate(made)) or made.info.counts.frames < 3 or not made.info.counts.labels:
         raise RuntimeError(f"{made.info.counts}, faults: {faults}")
@@ -37,7 +50,7 @@ def render(folder: Path) -> None:
 def serve() -> None:
     """Start the image server and request a frame."""
     command = [_program(), "serve", *_SMALL, "--engine", "heightfield", "--native-port", "0", "--port", "0"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, process_group=0) as server:
         try:
             assert server.stderr is not None
             address = next(word for line in server.stderr for word in line.split() if word.startswith("tcp://"))
@@ -55,7 +68,7 @@ def serve() -> None:
 def refuse(folder: Path) -> None:
     """Check that the engine `cycles` is refused in one line, and that nothing is written."""
     command = [_program(), "dataset", *_SMALL, "--out", folder]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = subprocess.run(command, capture_output=True, text=True, process_group=0)
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     print(*errors, sep="\n")
     if done.returncode != 2 or len(errors) != 1 or "Traceback" in done.stderr or folder.exists():
@@ -67,6 +80,4 @@ def _program() -> str:
 
 
 if __name__ == "__main__":
-    render(Path(sys.argv[1]) / "dataset")
-    serve()
-    refuse(Path(sys.argv[1]) / "cycles")
+    run_command_line(one_command(main))

@@ -71,10 +71,10 @@ def interrupted(code: str, words: tuple[str, ...], folder: Path, after_s: float)
     return process.returncode if not ended_before else 130, error, time.monotonic() - pressed
 
 
-def check(code: int, error: str, seconds: float) -> None:
+def check(code: int, error: str, seconds: float, *, lines: int = 0) -> None:
     assert "Traceback" not in error and "Exception ignored" not in error, error[-3000:]
     assert code in (130, 0), f"{code}\n{error[-3000:]}"  # 0: it ended in this moment
-    assert error.count(STOPPED) <= 1, error[-2000:]
+    assert lines <= error.count(STOPPED) <= 1, error[-2000:]
     if code == 130 and STOPPED in error:
         assert error.rstrip().endswith(STOPPED), error[-2000:]
     assert seconds <= MOST_S, f"{seconds:.1f} s\n{error[-2000:]}"
@@ -90,11 +90,19 @@ def test_a_program_ends_with_one_line(name, after_s, folder):
 @pytest.mark.parametrize("after_s", DELAYS_S[:4])
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_a_script_ends_with_one_line(name, after_s, folder):
+    check(*interrupted(script(name), ("--help",), folder, after_s))
+
+
+@pytest.mark.parametrize("after_s", [1.5, 3.0, 4.5])
+def test_a_script_and_the_program_that_it_runs_end_with_one_line(after_s, folder, tmp_path):
+    check(*interrupted(script("try_render.py"), (str(tmp_path),), folder, after_s), lines=1)
+
+
+def script(name: str) -> str:
+    """Python code that runs a script, either as `python scripts/name.py` or as `python -m scripts.name`."""
     path = ROOT / "scripts" / name
-    # Some run as `python scripts/name.py`, others as `python -m scripts.name`.
     code = f"sys.path[:0] = {[str(path.parent), str(ROOT)]!r}\nsys.argv[0] = {str(path)!r}\n"
-    code += f"runpy.run_path({str(path)!r}, run_name='__main__')"
-    check(*interrupted(code, ("--help",), folder, after_s))
+    return code + f"runpy.run_path({str(path)!r}, run_name='__main__')"
 
 
 LARGE = {
